@@ -57,7 +57,7 @@ def of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate |
         return objective_near(problem, iterate.here), iterate
     near = LogPosterior(problem, iterate.here.solver.carried(problem, iterate.theta)).linearise(iterate.theta)
     objective = objective_near(problem, near)
-    return objective, objective.iterate(near, iterate.noise)
+    return objective, objective.iterate(near, iterate.noise, all_shapes=True)
 
 
 def on_fewer_points(problem: Problem, theta: np.ndarray) -> tuple[Problem | None, Iterate | None]:

@@ -79,12 +79,15 @@ class Objective:
             return None
         return self.iterate(near.moved(theta), noise)
 
-    def iterate(self, here: Linearisation, noise: np.ndarray) -> Iterate | None:
-        """Return the iterate of solved residuals; None if the log-posterior is not finite."""
+    def iterate(self, here: Linearisation, noise: np.ndarray, *, all_shapes: bool = False) -> Iterate | None:
+        """Return the iterate of solved residuals; None if the log-posterior is not finite.
+
+        The noise parameters are the best ones near `noise`, with `all_shapes` those of `estimate_noise`.
+        """
         if not here.converged or not all(np.abs(r).max(initial=0.0) < OVERFLOWS for r in here.residuals):
             return None
         likelihood, factor = self.density.problem.likelihood, self.log_variance_factor
-        noise = estimate_noise(likelihood, here.residuals, noise, factor, of_total=self.of_total)
+        noise = estimate_noise(likelihood, here.residuals, noise, factor, of_total=self.of_total, all_shapes=all_shapes)
         value = self.density.objective(here, noise, factor, of_total=self.of_total)
         return Iterate(here.theta, here, noise, value) if np.isfinite(value) else None
 
@@ -181,9 +184,10 @@ def corrected(objective: Objective, end: End, report: Report = None) -> tuple[Ob
 def resumed(objective: Objective, end: End, report: Report = None, most: int = MAX_STEPS) -> End | None:
     """Climb on from the end of a climb with another objective; None if that is not finite there.
 
-    Earlier values in the history are shifted so that it goes on where the objective changes.
+    Noise that is best near the end may be far from the best one: shapes of its spectrum are tried from all of their
+    priors. Earlier values in the history are shifted so that it goes on where the objective changes.
     """
-    start = objective.iterate(end.iterate.here, end.iterate.noise)
+    start = objective.iterate(end.iterate.here, end.iterate.noise, all_shapes=True)
     if start is None:
         return None
     now, status, more = climb(objective, start, report=report, most=most)

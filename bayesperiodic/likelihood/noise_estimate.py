@@ -16,6 +16,9 @@ LOWEST_BESIDE_INPUTS = 14.0
 WITHIN = 1e-12
 # Difference of log-densities that is none.
 FLAT = 1e-11
+# Shapes of a spectrum that are tried between two quantiles of their priors, of its first parameter and of any other.
+TRIED_FIRST, TRIED_OTHERS, TRIED_TAIL = 25, 3, 5e-4
+TRIED_VARIANCES = np.linspace(-6.0, 6.0, 13)  # logarithms of factors
 
 
 def estimate_noise(
@@ -25,9 +28,11 @@ def estimate_noise(
     log_variance_factor: float | np.ndarray,
     *,
     of_total: bool = False,
+    all_shapes: bool = False,
 ) -> np.ndarray:
     """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
+    The optimum is that near the start, with `all_shapes` the best one from shapes of the whole support of their priors.
     For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with the factor f; otherwise it
     maximises the log-likelihood, its logarithms multiplied by f as in `Likelihood.__call__`, plus the log-prior. For
     `of_total` see `Likelihood.log_prior`.
@@ -40,7 +45,8 @@ def estimate_noise(
     if likelihood.shared and likelihood.free:
         without = Likelihood(likelihood.model, likelihood.blocks, likelihood.fixed)
         centre = estimate_noise(without, residuals, start, log_variance_factor)
-        return _maximise(likelihood, residuals, start, centre, log_variance_factor, of_total)
+        best = _maximise(likelihood, residuals, start, centre, log_variance_factor, of_total)
+        return _best_of(likelihood, residuals, best, centre, log_variance_factor, of_total) if all_shapes else best
     values, moments = start.copy(), likelihood.moments(residuals)
     for group, members in likelihood.groups():
         if not set(group) & set(likelihood.free):
@@ -61,7 +67,48 @@ def estimate_noise(
         total = sum(b.weight * float(r @ r) / unit for b, r, unit in zip(blocks, chosen, units, strict=True))
         size = np.where([name.startswith((VARIANCE, SCALE)) for name in group], max(total / count, TINY), part.guess())
         values[columns] = _maximise(part, chosen, values[columns], size, factor, of_total)
+        if all_shapes:
+            values[columns] = _best_of(part, chosen, values[columns], size, factor, of_total)
     return values
+
+
+def _best_of(
+    part: Likelihood,
+    residuals: Sequence[np.ndarray],
+    near: np.ndarray,
+    centre: np.ndarray,
+    log_variance_factor: float | np.ndarray,
+    of_total: bool,
+) -> np.ndarray:
+    """Return the best of the noise parameters (names,) near a start and of those from a grid of shapes.
+
+    The grid is over the shape and variance of one group of blocks after the other.
+    """
+
+    def density(values: np.ndarray) -> np.ndarray:
+        return part(residuals, values, log_variance_factor) + part.log_prior(values, of_total=of_total)
+
+    best = near
+    for group, members in part.groups():
+        columns = [k for k, name in enumerate(part.names) if name in group and name in part.free]
+        priors = [part.model.shape_priors.get(part.names[k].partition("[")[0]) for k in columns]
+        if not any(priors) or not all(part.blocks[b].spectral for b in members):
+            continue
+        axes, count = [], TRIED_FIRST
+        for k, prior in zip(columns, priors, strict=True):
+            if prior is None:
+                axes.append(centre[k] * np.exp(TRIED_VARIANCES))
+                continue
+            ends = np.log(prior.quantile(np.array([TRIED_TAIL, 1.0 - TRIED_TAIL])))
+            axes.append(np.exp(np.linspace(ends[0], ends[1], count)))
+            count = TRIED_OTHERS
+        grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=-1)
+        tried = np.tile(best, (len(grid), 1))
+        tried[:, columns] = grid
+        values = np.concatenate([density(some) for some in np.array_split(tried, TRIED_FIRST)])
+        there = _maximise(part, residuals, tried[np.argmax(values)], centre, log_variance_factor, of_total)
+        best = max(best, there, key=density)
+    return best
 
 
 def log_supports(likelihood: Likelihood) -> np.ndarray:

@@ -16,6 +16,8 @@ from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 # draws left out by more than LEAST_SCORE_GAIN.
 COMPONENT_NUMBERS, HEAVY_TAILS, LIGHT_TAILS, LEAST_SCORE_GAIN = (1, 2, 3, 4, 6, 8), 5.0, 30.0, 0.01
 WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
+# The same of a component that is wider along the heaviest tails only.
+TAIL_WEIGHT, TAIL_FACTOR = 0.1, 3.0
 # Most draws used in a fit, and draws needed per coordinate and component.
 MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
@@ -248,6 +250,28 @@ def _with_wider(mixture: StudentMixture, degrees: float | None = None) -> Studen
     factors, means = np.concatenate([mixture.factors, WIDER_FACTOR * mixture.factors]), np.tile(mixture.means, (2, 1))
     tails = mixture.degrees if degrees is None else np.full(count, degrees)
     return StudentMixture(weights, means, factors, np.append(tails, np.full(count, HEAVY_TAILS)), mixture.curvature)
+
+
+def with_tail(mixture: StudentMixture, points: np.ndarray) -> StudentMixture:
+    """Return a mixture with a component that is wider along the heaviest tails of points (points, dimension) only.
+
+    In many dimensions a component that is wider along all of them hardly covers one long tail. The direction is the
+    eigenvector of Σ|z|²zzᵀ of the whitened points z with the largest eigenvalue: fourth-order blind identification
+    (J.-F. Cardoso, Source separation using higher order moments, ICASSP 1989, 2109-2112).
+    """
+    straight = mixture.straightened(points)
+    mean, factor = straight.mean(axis=0), np.linalg.cholesky(np.cov(straight.T))
+    white = np.linalg.solve(factor, (straight - mean).T)
+    heaviest = np.linalg.eigh((white * np.sum(white**2, axis=0)) @ white.T)[1][:, -1]
+    wider = factor @ (np.eye(len(mean)) + (TAIL_FACTOR - 1.0) * np.outer(heaviest, heaviest))
+    triangular = np.linalg.qr(wider.T)[1].T
+    return StudentMixture(
+        np.append((1.0 - TAIL_WEIGHT) * mixture.weights, TAIL_WEIGHT),
+        np.vstack([mixture.means, mean]),
+        np.concatenate([mixture.factors, triangular[None] * np.sign(np.diag(triangular))]),
+        np.append(mixture.degrees, HEAVY_TAILS),
+        mixture.curvature,
+    )
 
 
 # Fraction of the steps that propose from the mixture, if there is one; the other steps move within the ensembles.

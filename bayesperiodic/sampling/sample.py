@@ -53,6 +53,7 @@ from bayesperiodic.sampling.proposals import (
     expected_time,
     fit_mixture,
     parts,
+    with_tail,
 )
 from bayesperiodic.sampling.robust import add_robust
 from bayesperiodic.sampling.starts import (
@@ -444,9 +445,10 @@ class _EnsembleRun:
         chains = self._chains(half)
         new = self._expected_time(present, last) if present else np.inf
         if min(np.ptp(chains[..., k]) for k in range(self.density.dimension)) > 0.0:
-            fitted = fit_mixture(chains.thinned(MOST_FITTED_DRAWS), [] if first is None else [first])
-            if not present or self._expected_time(fitted, half) < self._expected_time(present, half):
-                state["mixture"] = fitted.as_lists()
+            draws = chains.thinned(MOST_FITTED_DRAWS)
+            fitted = fit_mixture(draws, [] if first is None else [first])
+            tried = [*filter(None, [present]), fitted, with_tail(fitted, draws.reshape(-1, draws.shape[2]))]
+            state["mixture"] = min(tried, key=lambda one: self._expected_time(one, half)).as_lists()
         rounds, expected, enough = state["steps"] // ROUND, np.inf, max(FAST_MIXTURE, state["steps"] / LENGTHS)
         if present and rounds > 1 and new <= enough:
             expected = max(new, self._expected_time(StudentMixture.from_lists(state["mixture"]), half))
