@@ -5,7 +5,7 @@ from dataclasses import replace
 import emcee
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from bayesperiodic.sampling.moves import WithinEnsembles, from_mixture, moves
 from bayesperiodic.sampling.proposals import (
@@ -13,6 +13,7 @@ from bayesperiodic.sampling.proposals import (
     expected_time,
     fit_mixture,
     normal_mixture,
+    with_tail,
 )
 
 
@@ -147,6 +148,34 @@ def curved(count, seed):
     wide = np.random.default_rng(seed).standard_normal((4, count, 3))
     narrow = wide[..., 1] ** 2 - 2.0 * wide[..., 1] * wide[..., 2] + 0.1 * wide[..., 0]
     return np.concatenate([narrow[..., None], wide[..., 1:]], axis=2)
+
+
+def test_a_tail_in_many_dimensions_is_covered_along_its_direction():
+    """Logarithms of gamma variates, which have a tail exp(0.5 x), among normal ones, turned at random.
+
+    The component has mean and covariance of the draws, but three times the sd along the tail.
+
+    """
+    random, dimension, count = np.random.default_rng(4), 20, 20_000
+    plain = random.standard_normal((count, dimension))
+    plain[:, 0] = np.log(random.gamma(0.5, size=count))
+    plain[:, 0] = (plain[:, 0] - special.digamma(0.5)) / np.sqrt(special.polygamma(1, 0.5))
+    turn = stats.ortho_group.rvs(dimension, random_state=random)
+    draws = plain @ turn.T
+    log_density = stats.norm.logpdf(plain[:, 1:]).sum(axis=1)
+    natural = special.digamma(0.5) + np.sqrt(special.polygamma(1, 0.5)) * plain[:, 0]
+    log_density += 0.5 * natural - np.exp(natural)
+    normal = StudentMixture(
+        np.ones(1), draws.mean(axis=0)[None], np.linalg.cholesky(np.cov(draws.T))[None], np.array([30.0])
+    )
+    tailed = with_tail(normal, draws)
+    assert tailed.weights.sum() == pytest.approx(1.0)
+    factor = tailed.factors[-1]
+    assert np.allclose(factor, np.tril(factor)) and np.all(np.diag(factor) > 0.0)
+    expected = np.cov(draws.T) + 8.0 * np.outer(turn[:, 0], turn[:, 0])
+    assert np.allclose(factor @ factor.T, expected, atol=0.3)
+    before, after = (expected_time(one, draws, log_density, 0.8) for one in (normal, tailed))
+    assert after < 0.5 * before
 
 
 def test_curvature_of_draws_is_found_and_the_mixture_follows_it():
