@@ -405,7 +405,8 @@ def recorded_orbits(problem: Description, solver: ResponseSolver, theta: np.ndar
 
     Solutions followed from the solver's anchors are taken if they are of the recorded kind and explain half of the
     variance of each channel. Otherwise those from the experiments' guesses, or from the measured outputs, are solved
-    too. Where none converges it is the first.
+    too: by default the anchors are at the medians of the priors, where the model may have no orbit, or follow another
+    branch. Where none converges it is the first.
     """
     first = solver.solutions(theta)
     chosen = {name: (solution, _misfit(problem, solver, theta, name)) for name, solution in first.items()}
