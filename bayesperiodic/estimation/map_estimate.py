@@ -38,6 +38,7 @@ from bayesperiodic.estimation.covariance import (
     input_loadings,
     uncertainty,
 )
+from bayesperiodic.estimation.fit_warnings import second_order_warnings, shape_warnings, table_warnings
 from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
@@ -60,9 +61,6 @@ from bayesperiodic.estimation.modes import (
     with_images,
 )
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
-from bayesperiodic.estimation.second_order import second_order_warnings
-from bayesperiodic.estimation.shape import shape_warnings
-from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.likelihood.noise import Relative
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
