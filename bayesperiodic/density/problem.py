@@ -1,7 +1,7 @@
 """Problem: a model, experiments and priors, and the posterior density they define."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -10,10 +10,13 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.initial_orbits import measured_orbits
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, SAMPLED, Evaluation, LogPosterior
-from bayesperiodic.density.recorded_orbits import recorded_orbits
+from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED, other_orbit, unexplained
 from bayesperiodic.density.responses import Guesses, ResponseSolver
 from bayesperiodic.likelihood.input_noise import EXACT, InputErrors, same
+from bayesperiodic.models.model import CondensedModel
+from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem import problem_text
 from bayesperiodic.problem.description import Description, written_out
@@ -395,3 +398,45 @@ class Problem(Description):
             By experiment; a solve that fails has another status than "converged".
         """
         return recorded_orbits(self, self.density().solver, self.vector(self.completed(theta)))
+
+
+def recorded_orbits(problem: Description, solver: ResponseSolver, theta: np.ndarray) -> dict[str, PeriodicSolution]:
+    """Return the solution of every experiment at θ (names,) that explains the recording best.
+
+    Solutions followed from the solver's anchors are taken if they are of the recorded kind and explain half of the
+    variance of each channel. Otherwise those from the experiments' guesses, or from the measured outputs, are solved
+    too: by default the anchors are at the medians of the priors, where the model may have no orbit, or follow another
+    branch. Where none converges it is the first.
+    """
+    first = solver.solutions(theta)
+    chosen = {name: (solution, _misfit(problem, solver, theta, name)) for name, solution in first.items()}
+    for other in _others(problem, solver, theta, first):
+        if all(misfit <= MOST_UNEXPLAINED for _, misfit in chosen.values()):
+            break
+        solutions = other.solutions(theta)
+        for name, (_, least) in chosen.items():
+            if least > MOST_UNEXPLAINED and (misfit := _misfit(problem, other, theta, name)) < least:
+                chosen[name] = solutions[name], misfit
+    return {name: solution for name, (solution, _) in chosen.items()}
+
+
+def _others(
+    problem: Description, solver: ResponseSolver, theta: np.ndarray, first: dict[str, PeriodicSolution]
+) -> Iterator[ResponseSolver]:
+    yield solver.anchored(theta)
+    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
+    if not unable and all(np.isfinite([*s.states.values()]).all() for s in first.values()):
+        near = {name: solution.states for name, solution in first.items()}
+        yield ResponseSolver.start(problem, theta, measured_orbits(problem, theta, near, 1).states)
+
+
+def _misfit(problem: Description, solver: ResponseSolver, theta: np.ndarray, name: str) -> float:
+    """Return the largest unexplained fraction of a channel's variance, 1 more for an orbit of another kind.
+
+    Infinite where the solve failed.
+    """
+    simulation = solver.solve(theta[None], keep=True, polish=True)
+    if simulation.statuses(name)[0] != CONVERGED:
+        return np.inf
+    response, observation = simulation.at(0).response(name), problem.observations[name]
+    return max(unexplained(observation, response).values(), default=0.0) + bool(other_orbit(observation, response))

@@ -1,20 +1,20 @@
 """Climbs to the optimum: from a start, from the measured orbits, and from draws of the priors."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from bayesperiodic._linalg import unwarned
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.density.condensed_orbits import near_data
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.density.responses import InitialOrbit, ResponseSolver, initial_orbit
 from bayesperiodic.density.sweeps import tables
 from bayesperiodic.estimation.adequacy import misfit_at
 from bayesperiodic.estimation.gauss_newton import (
@@ -27,9 +27,12 @@ from bayesperiodic.estimation.gauss_newton import (
     preference,
 )
 from bayesperiodic.estimation.modes import SEPARATE_SDS, SHOWN_AFTER, optimum_of
-from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.batch import Anchor
+from bayesperiodic.periodic.condensed import CondensedEquations
+from bayesperiodic.periodic.element_forces import times
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
+from bayesperiodic.problem.description import Description
 
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
@@ -44,6 +47,12 @@ SMALL_PART = 0.1
 HALVINGS_FROM_DRAWS = 3
 # Standard deviation of a phase of which nothing is known [rad].
 RANDOM_PHASE = np.pi / np.sqrt(3.0)
+# Errors added to tables: of sizes, relative to the largest of the table, of phases [rad], and of relative frequencies.
+WIDE_SHARE, WIDE_PHASE, WIDE_RESOLUTION = 0.1, 0.1, 0.02
+# Harmonics that give the size of the forces, and the part of the harmonics, the highest, that give the noise.
+FIRST_HARMONICS, OF_NOISE = 3, 0.25
+# Smallest noise of an output, relative to its largest harmonic, and smallest singular values in a harmonic.
+LEAST_NOISE, LEAST_SINGULAR = 1e-6, 1e-6
 
 
 def objective_near(problem: Problem, near: Linearisation) -> Objective:
@@ -313,3 +322,111 @@ def pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np
     having = [(e, signals[e.name][channel]) for e in problem.experiments if channel in signals[e.name]]
     values = [part[e.measured_points] if channel in e.outputs else part for e, part in having]
     return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
+
+
+def widened(problem: Problem) -> Problem | None:
+    """Return the problem with larger errors of its tables; None without tables.
+
+    A row that was measured before a jump must be reached by the branch of the model, within the resolution of its
+    frequency, and precise amplitudes leave each local optimum apart from the others. With larger errors the same rows
+    have few optima, from which the climbs to those of the tables are short.
+    """
+    wide: dict[str, Experiment] = {}
+    for table in tables(problem).values():
+        largest = _largest(table)
+        wide |= {e.name: _widened(e, largest) for e in table}
+    if not wide:
+        return None
+    return problem.replace(experiments=[wide.get(e.name, e) for e in problem.experiments])
+
+
+def _largest(table: Iterable[Experiment]) -> dict[str, float]:
+    """Return the largest value of each measured quantity."""
+    largest: dict[str, float] = {}
+    for one in (one for e in table for one in e.measurements if not one.signed):
+        largest[one.label] = max(largest.get(one.label, 0.0), one.value)
+    return largest
+
+
+def _widened(experiment: Experiment, largest: dict[str, float]) -> Experiment:
+    assert experiment.sweep is not None
+    measurements = [
+        one if one.sd is None else replace(one, sd=float(np.hypot(one.sd, _added_error(one.label, largest))))
+        for one in experiment.measurements
+    ]
+    resolution = max(experiment.sweep.resolution, WIDE_RESOLUTION)
+    return replace(experiment, measurements=measurements, sweep=replace(experiment.sweep, resolution=resolution))
+
+
+def _added_error(label: str, largest: dict[str, float]) -> float:
+    return WIDE_SHARE * largest[label] if label in largest else WIDE_PHASE
+
+
+def near_data(problem: Description, theta: np.ndarray) -> Linearisation | None:
+    """Return residuals and Jacobian at θ (names,) on the orbits that the data show, or from rest where that fails.
+
+    None for models that are not condensed, and where experiments have guesses, anchors or are no whole periods.
+    Friction and contact let several orbits exist at the same parameters, and from rest the solve leads to one with
+    small motions. The frequency response of the linear structure is known at any parameters: from outputs and inputs
+    follow the forces of the elements, without their laws, and from the forces their displacements, which start the
+    solve.
+    """
+    of_others = problem.anchors or tables(problem) or any(e.condition or e.guess for e in problem.experiments)
+    if not isinstance(problem.model, CondensedModel) or of_others:
+        return None
+    anchors = {e.name: _shown_orbit(problem, e, theta) for e in problem.experiments}
+    density = LogPosterior(problem, ResponseSolver(problem, anchors))
+    return Linearisation(theta, density.solver, density.comparisons)
+
+
+def _shown_orbit(problem: Description, experiment: Experiment, theta: np.ndarray) -> InitialOrbit:
+    name, equations = experiment.name, problem.equations[experiment.name]
+    assert isinstance(equations, CondensedEquations)
+    shown = shown_displacements(equations, problem.parameters(theta[None], name)[0], experiment)
+    orbit = None if shown is None else initial_orbit(problem, name, theta, "static", (equations, shown))
+    return orbit if orbit and orbit.derivatives else initial_orbit(problem, name, theta, "static")
+
+
+@unwarned
+def shown_displacements(
+    equations: CondensedEquations, parameters: np.ndarray, experiment: Experiment
+) -> np.ndarray | None:
+    """Return displacements of the elements (points, elements) that fit the measured outputs; None without such.
+
+    In each harmonic the forces f minimise the squares of the outputs' errors in units of the noise, and of f in units
+    of the largest force, which keeps it finite where the outputs do not show it. Sensors are taken as ideal.
+    """
+    channels = [c for c in equations.model.outputs if c in experiment.outputs]
+    if experiment.mask is not None or not channels or not equations.count:
+        return None
+    measured = harmonics(np.stack([experiment.outputs[c] for c in channels], axis=1))
+    count, points = len(measured), 1 << (2 * len(measured) - 1).bit_length()
+    noise = np.median(np.abs(measured[int((1.0 - OF_NOISE) * count) :]), axis=0)
+    noise = np.maximum(noise, LEAST_NOISE * np.abs(measured).max(axis=0))
+    if not (count > FIRST_HARMONICS and np.all(noise > 0.0)):
+        return None
+    weights = np.stack([_contained(experiment, c, count) for c in channels], axis=1) / noise
+    matrices, load = equations.matrices(parameters, points)[0], equations.input_harmonics(points)
+    rows = [equations.model.outputs.index(c) for c in channels]
+    gains = matrices.y_f[:count, rows] * weights[..., None]
+    missing = weights * (times(matrices.y_u[:, rows], load)[:count] - measured)
+    first = [
+        np.linalg.lstsq(*pair, rcond=LEAST_SINGULAR)[0]
+        for pair in zip(gains[:FIRST_HARMONICS], missing[:FIRST_HARMONICS], strict=True)
+    ]
+    largest = float(np.abs(first).max())
+    if not 0.0 < largest < np.inf:
+        return None
+    transposed = np.swapaxes(gains.conj(), -1, -2)
+    forces = np.linalg.solve(
+        transposed @ gains + np.eye(equations.count) / largest**2, times(transposed, missing)[..., None]
+    )
+    acting = resized(forces[..., 0], points)
+    return on_grid(times(matrices.d_u, load) - times(matrices.d_f, acting), points)
+
+
+def _contained(experiment: Experiment, channel: str, count: int) -> np.ndarray:
+    """Return 1 for the harmonics that the output contains and 0 for others, (harmonics,)."""
+    result = 1.0 * (np.arange(count) <= experiment.harmonics.get(channel, count))
+    result[[h for h in experiment.unmeasured.get(channel, ()) if h < count]] = 0.0
+    return result

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,7 +38,7 @@ from bayesperiodic.estimation.covariance import (
     input_loadings,
     uncertainty,
 )
-from bayesperiodic.estimation.frequencies import updated_frequencies
+from bayesperiodic.estimation.fit_warnings import second_order_warnings, shape_warnings, table_warnings
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
     End,
@@ -60,14 +60,16 @@ from bayesperiodic.estimation.modes import (
     with_images,
 )
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
-from bayesperiodic.estimation.second_order import second_order_warnings
-from bayesperiodic.estimation.shape import shape_warnings
-from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.likelihood.noise import Relative
+from bayesperiodic.likelihood.orbit_frequency import FREQUENCY
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
+from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MOST_SHOWN_MODES = 3
 # Standard deviations from which on an amplitude of a noisy harmonic is nearly normal.
@@ -350,7 +352,7 @@ def _describe(
             {e.name: model_inputs(problem, e, best.theta) for e in problem.experiments},
             estimated_inputs(problem, best).sd,
             problem.input_errors,
-            updated_frequencies(problem, best, solutions, covariance),
+            _updated_frequencies(problem, best, solutions, covariance),
         ),
         search=Search(
             history,
@@ -465,3 +467,34 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
         f"start: must have a finite log-posterior, got {values}, where the periodic solve ended {ended}. Give {cures} "
         f"{compared_with_data(problem, theta)} {unit_error(problem, theta)}"
     ).rstrip()
+
+
+def _updated_frequencies(
+    problem: Problem, estimate: Iterate, solutions: Mapping[str, PeriodicSolution], covariance: np.ndarray
+) -> "pd.DataFrame":
+    """Return measured and estimated frequencies of experiments whose frequency is uncertain, see `MapEstimate`."""
+    import pandas as pd
+
+    likelihood, given, rows = problem.likelihood, estimated_inputs(problem, estimate).covariances, {}
+    spread = np.nan_to_num(covariance, posinf=0.0)
+    for e in problem.experiments:
+        members = [b for b, block in enumerate(likelihood.blocks) if block.experiment == e.name]
+        if not e.frequency_se > 0.0:
+            continue
+        if problem.model.autonomous:
+            (block,) = [b for b in members if likelihood.blocks[b].channel == FREQUENCY]
+            slope = estimate.here.jacobian[block][:, 0]
+            sd = np.sqrt(slope @ spread @ slope)
+        elif e.name in given:
+            # The expected errors given θ are −S⁻¹·Lᵀ·p·r, and change by S⁻¹·Lᵀ·p·∂ŷ/∂θ.
+            precisions = likelihood.precisions(members, estimate.noise)
+            weighed = np.concatenate(
+                [np.broadcast_to(p, likelihood.blocks[b].size) for b, p in zip(members, precisions, strict=True)]
+            )
+            jacobian = np.concatenate([estimate.here.jacobian[b] for b in members], axis=1)
+            slope = jacobian @ (weighed * (likelihood.loadings[e.name] @ given[e.name][-1]))
+            sd = np.sqrt(given[e.name][-1, -1] + slope @ spread @ slope)
+        else:
+            sd = 1.0
+        rows[e.name] = (e.frequency, e.frequency_se, solutions[e.name].frequency, e.frequency_se * min(float(sd), 1.0))
+    return pd.DataFrame.from_dict(rows, orient="index", columns=["measured", "se", "estimate", "sd"], dtype=float)

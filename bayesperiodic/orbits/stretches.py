@@ -182,14 +182,14 @@ def unbiased_windows(
 
 
 def local_fit(
-    samples: Stretches, at: np.ndarray, stretch: np.ndarray, half: int = SMALLEST_WINDOW, degree: int = VALUE_DEGREE
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, half: int = SMALLEST_WINDOW
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values of polynomials on 2·half samples each, and their variance for unit noise."""
-    centre = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
+    centre = np.polynomial.legendre.legvander(np.zeros(1), VALUE_DEGREE)[0]
     values, gains = [], []
-    for basis, reference, local in _local_bases(samples, at, stretch, half, degree):
+    for basis, reference, local in _local_bases(samples, at, stretch, half, VALUE_DEGREE):
         normal = basis.transpose(0, 2, 1) @ basis
-        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(basis), degree + 1, 1)))
+        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(basis), VALUE_DEGREE + 1, 1)))
         values.append(reference + (weights.transpose(0, 2, 1) @ local)[:, 0])
         gains.append((weights[..., 0] ** 2).sum(1))
     return np.concatenate(values), np.concatenate(gains)

@@ -138,7 +138,7 @@ class Batch:
             status. Unless it is the only one, it is not solved for them. Ignored with `without`.
         """
         first, grid = self._first, self._first.grid
-        every, solution = _unsolved(first, self._size, parameters, keep)
+        every, solution = _unsolved(first, self._anchors.z, parameters, keep)
         solution.frequency[:] = self._sets.frequency[:, None]
         if without is not None:
             solution.status[without] = STALLED
@@ -234,7 +234,7 @@ class AutonomousBatch:
         are not followed, and get its status.
         """
         first = self._first
-        every, solution = _unsolved(first, len(self._orbits.z), parameters, keep)
+        every, solution = _unsolved(first, self._orbits.z, parameters, keep)
         follow_many = kernels("autonomous", first.count, first.grid.stencil).follow_many
         before = first.functions, first.grid.packed, self._sets, self._orbits, every
 
@@ -248,13 +248,14 @@ class AutonomousBatch:
 
 
 def _unsolved(
-    equations: PeriodicEquations, sets: int, parameters: np.ndarray, keep: bool
+    equations: PeriodicEquations, anchors: np.ndarray, parameters: np.ndarray, keep: bool
 ) -> tuple[np.ndarray, BatchSolution]:
-    """Return the parameters (sets, solves, parameters) and arrays for the solutions."""
+    """Return the parameters (sets, solves, parameters) and arrays for solutions as those of the anchors (sets, …)."""
+    sets, points, count = anchors.shape
     every = np.empty((sets, *parameters.shape[-2:]))
     every[:] = parameters
-    shape, points = every.shape[:2], equations.grid.points
-    z = np.empty((*shape, points if keep else 0, equations.count))
+    shape = every.shape[:2]
+    z = np.empty((*shape, points if keep else 0, count))
     outputs = np.empty((*shape, points, equations.model.kernels.channels))
     return every, BatchSolution(z, outputs, np.empty(shape), *np.zeros((2, *shape), dtype=int))
 

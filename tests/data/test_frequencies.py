@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesperiodic.data import harmonics
-from bayesperiodic.data.phase_diffusion import Diffusion
+from bayesperiodic.data.harmonics import Diffusion
 
 
 def first_peak(time, channels):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.phase_diffusion import phase_diffusion
+from bayesperiodic.data.harmonics import phase_diffusion
 
 FREQUENCY, THIRD = 0.7, 0.3
 

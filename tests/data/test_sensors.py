@@ -8,7 +8,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic import _fourier
-from bayesperiodic.data import sensors
+from bayesperiodic.data import inspection
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import HarmonicFit, fit_harmonics
 from bayesperiodic.data.saturation import means_of, phase_bins, saturation_of
@@ -163,7 +163,7 @@ def test_others_at_a_phase_are_left_out_if_two_percent_of_them_are_clipped(share
     """Of 1000 samples at each of ten phases, whose intervals they fill."""
     phase = np.repeat(np.arange(1000), 10) + np.tile(np.arange(10) / 10, 1000)
     clipped = 10 * np.arange(round(1000 * share)) + 3
-    beside = sensors._same_phases(phase, clipped)
+    beside = inspection._same_phases(phase, clipped)
     assert beside.tolist() == (10 * np.arange(1000) + 3).tolist() * left_out
 
 
@@ -178,7 +178,7 @@ def example(highest):
 
 def test_harmonics_that_are_shown_and_not_determined_are_named_with_share_period_and_channel():
     used, fit = example(3)
-    text = sensors.undetermined(used, fit, 9)
+    text = inspection.undetermined(used, fit, 9)
     assert text.startswith(
         "recording: must have samples at all phases of its period, got 'run', in which none are at 40% of"
     )
@@ -186,9 +186,9 @@ def test_harmonics_that_are_shown_and_not_determined_are_named_with_share_period
         "each period of 0.25 s: the others determine 2 harmonics, and 'x' has 3 at least. Record again without" in text
     )
     one = fit_harmonics(used.time, used.values, 4.0, 1)
-    assert "the others determine 1 harmonic, and 'x' has" in sensors.undetermined(used, one, 9)
-    assert sensors.undetermined(used, fit, 2) == ""  # no more are resolved
-    assert sensors.undetermined(*example(2), 9) == "" == sensors.undetermined(*example(1), 9)
+    assert "the others determine 1 harmonic, and 'x' has" in inspection.undetermined(used, one, 9)
+    assert inspection.undetermined(used, fit, 2) == ""  # no more are resolved
+    assert inspection.undetermined(*example(2), 9) == "" == inspection.undetermined(*example(1), 9)
 
 
 PERIOD, BEFORE = 0.5, 80
@@ -228,7 +228,7 @@ def test_flat_tops_are_those_of_the_samples_without_faults(share):
     other = wave() + noise(4, 1e-3)
     faults = [ChannelFaults(stuck=stuck, brief=brief), ChannelFaults(outliers=outliers)]
     faults, used, fit = part_used(values, other, faults=faults, series=np.stack([amplitudes, np.r_[ORDERS, [0] * 16]]))
-    sensors.describe(faults, used, fit, BEFORE)
+    inspection.describe_limits(faults, used, fit, BEFORE)
     sound = ~wrong if share < 0.9 else np.ones(3000, dtype=bool)
     phase = used.time / PERIOD
     means = means_of(phase_bins(phase[sound]), fit.residuals[0][sound], amplitudes, 0.0)
@@ -254,7 +254,7 @@ def test_clipped_samples_are_beside_noise_that_is_more_than_half_a_step_and_a_th
     outside = np.array([BEFORE - 75, BEFORE - 25])  # at phases of the lowest values, if counted from the end
     fault = ChannelFaults(step=step, high=high + BEFORE, low=outside)
     (fault,), used, fit = part_used(values, faults=[fault])
-    sensors.describe([fault], used, fit, BEFORE)
+    inspection.describe_limits([fault], used, fit, BEFORE)
     assert fault.noisy == noisy
     number = phase_bins(used.time / PERIOD).centre.size
     place = np.floor((PLACE + 7.0 / PERIOD + 0.5 / number) % 1.0 * number)
@@ -269,7 +269,7 @@ def test_a_level_without_noise_is_that_of_its_clipped_samples():
             values + np.where(values < LEVEL, noise(6, size), 0.0), faults=[ChannelFaults(high=high)],
             series=amplitudes[None],
         )  # fmt: skip
-        sensors.describe([fault], used, fit, BEFORE)
+        inspection.describe_limits([fault], used, fit, BEFORE)
         assert fault.saturation is not None and fault.noisy == bool(size)
         assert fault.saturated.tolist() == saturated and (fault.saturation_bias > 10.0) == (not size)
 
@@ -283,12 +283,12 @@ def test_impulses_of_random_size_in_the_part_used_are_heavy_tails():
     given = np.sort([*outside, *(places + BEFORE)])
     faults = [ChannelFaults(outliers=given), ChannelFaults(outliers=given, high=np.array([BEFORE + 33]))]
     faults, used, fit = part_used(values, values, faults=faults)
-    sensors.describe(faults, used, fit, BEFORE)
+    inspection.describe_limits(faults, used, fit, BEFORE)
     assert faults[0].tails.tolist() == (places + BEFORE).tolist() and faults[1].tails.size == 0
     assert [fault.outliers.tolist() for fault in faults] == [outside] * 2
     # Values that replace the signal follow it, and are faults.
     values = wave() + noise(7, 1e-3)
     values[places] = 0.0
     (fault,), used, fit = part_used(values, faults=[ChannelFaults(outliers=given)])
-    sensors.describe([fault], used, fit, BEFORE)
+    inspection.describe_limits([fault], used, fit, BEFORE)
     assert fault.outliers.tolist() == given.tolist() and fault.tails.size == 0

@@ -9,7 +9,7 @@ from scipy.special import ndtri
 import bayesperiodic as bp
 from bayesperiodic.data.measurements import Amplitude, Phase
 from bayesperiodic.data.sweep import Sweep
-from bayesperiodic.estimation import climbs, modes, profile, wide_tables
+from bayesperiodic.estimation import climbs, modes, profile
 from bayesperiodic.estimation.gauss_newton import End
 from bayesperiodic.estimation.profile import Ridge
 from bayesperiodic.models.model import CondensedModel
@@ -136,7 +136,7 @@ def test_starts_outside_of_the_prior_or_without_orbits_are_none():
     first = climbs.first_iterate(problem, np.array([801.0, 30.0, 20.0]))
     assert np.isfinite(first.objective) and first.theta == pytest.approx([801.0, 30.0, 20.0])
     assert climbs.in_wide_tables(problem, first.theta, np.empty((0, 3)), False) == []
-    assert wide_tables.widened(problem) is None
+    assert climbs.widened(problem) is None
     objective = climbs.objective_near(problem, first.here)
     end = climbs.climbed(objective, first, False)
     assert end.status == "converged" and climbs.on_best_sheets(problem, end, False) is end
@@ -207,7 +207,7 @@ def test_tables_are_widened_by_a_tenth_of_their_largest_value():
         model=SimpleNamespace(autonomous=False), experiments=[*points, alone],
         replace=lambda experiments: kept.update({e.name: e for e in experiments}) or "wider",
     )  # fmt: skip
-    assert wide_tables.widened(problem) == "wider" and [*kept] == ["a", "b", "c", "d", "alone"]
+    assert climbs.widened(problem) == "wider" and [*kept] == ["a", "b", "c", "d", "alone"]
     assert kept["alone"] is alone
     for name, largest, resolution in (("a", 5.0, 0.05), ("b", 5.0, 0.05), ("c", 30.0, 0.02), ("d", 30.0, 0.02)):
         size, phase = kept[name].measurements

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.estimation import profile, table_orbits, units
+from bayesperiodic.estimation import fit_warnings, profile, units
 from bayesperiodic.estimation.profile import Point, Ridge
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 
@@ -96,13 +96,13 @@ def warned(monkeypatch, solutions, jumps=None, condensed=None, smooth=()):
     seen = []
     stand_ins["early_jumps"] = lambda problem, theta, sheets: seen.append(sheets) or jumps or {}
     for name, function in stand_ins.items():
-        monkeypatch.setattr(table_orbits, name, function)
+        monkeypatch.setattr(fit_warnings, name, function)
     if condensed:
-        monkeypatch.setattr(table_orbits, "CondensedModel", SimpleNamespace)
+        monkeypatch.setattr(fit_warnings, "CondensedModel", SimpleNamespace)
     problem = SimpleNamespace(
         vector=lambda theta: theta["k"], equations={name: f"equations {name}" for name in names}, model=condensed
     )
-    texts = list(table_orbits.table_warnings(problem, SimpleNamespace(theta={"k": 3.0}, solutions=solutions)))
+    texts = list(fit_warnings.table_warnings(problem, SimpleNamespace(theta={"k": 3.0}, solutions=solutions)))
     expected = {name: (3.0, (f"equations {name}", solution)) for name, solution in solutions.items()}
     assert seen == ([expected] if names else [])
     return texts
@@ -124,7 +124,7 @@ def test_points_beyond_a_fold_are_listed_up_to_four(monkeypatch):
         "'b', 'c', 'd' and 2 more; the branch of 'a' ends at a fold at 0.9 Hz. The model may lack a term, or sweep and "
         "resolution may not be those of the measurement."
     )
-    listed = table_orbits._listed
+    listed = fit_warnings._listed
     assert (listed([*"abcde"]), listed([*"abcd"])) == ("'a', 'b', 'c', 'd' and 1 more", "'a', 'b', 'c', 'd'")
     (text,) = warned(monkeypatch, {"a": orbit(), "b": orbit(frequency=1.1)})
     assert text.startswith("1 points of response tables were measured where") and ": 'b'; the branch of 'b'" in text

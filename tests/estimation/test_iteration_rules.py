@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bayesperiodic.estimation import gauss_newton, second_order, shape
+from bayesperiodic.estimation import fit_warnings, gauss_newton
 from bayesperiodic.estimation.gauss_newton import End, Iterate, Objective, climb, inverse_hessian, prior_only, resumed
 from bayesperiodic.estimation.laplace import JointLaplace, _moved_together
 
@@ -257,7 +257,7 @@ def of_second_order(rate, change, solvable=1.0):
 
     objective = SimpleNamespace(density=SimpleNamespace(problem=problem), at=at)
     start = at(np.zeros(2), None, None)
-    return second_order.second_order(objective, start), [*second_order.second_order_warnings(objective, start)]
+    return fit_warnings.second_order(objective, start), [*fit_warnings.second_order_warnings(objective, start)]
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def of_shape(fall, covariance=((4.0, 0.6), (0.6, 0.25)), found=True):
     )  # fmt: skip
     objective = SimpleNamespace(density=SimpleNamespace(problem=problem, with_settings=lambda **settings: density))
     joint = JointLaplace({"a": 1.0, "b": 2.0}, table, -1.0)
-    texts = [*shape.shape_warnings(objective, SimpleNamespace(here=SimpleNamespace(solver=None)), joint)]
+    texts = [*fit_warnings.shape_warnings(objective, SimpleNamespace(here=SimpleNamespace(solver=None)), joint)]
     assert asked["noise"].tolist() == [0.3, 1.0]
     return texts
 
@@ -312,7 +312,7 @@ def normal(*u, covariance=((4.0, 0.6), (0.6, 0.25))):
 @pytest.mark.parametrize("name", NAMES)
 def test_falls_of_four_times_or_a_quarter_of_the_normal_one_are_named(monkeypatch, distance, factor, seen, name):
     """Steeper falls matter up to two standard deviations; each parameter takes the others with it."""
-    monkeypatch.setattr(shape, "tables", lambda problem: {"table": []})
+    monkeypatch.setattr(fit_warnings, "tables", lambda problem: {"table": []})
     row, sd = NAMES.index(name), {"a": 2.0, "b": 0.5}[name]
 
     def fall(*u):
@@ -329,11 +329,11 @@ def test_falls_of_four_times_or_a_quarter_of_the_normal_one_are_named(monkeypatc
 
 
 def test_shapes_are_those_of_tables_with_a_covariance(monkeypatch):
-    monkeypatch.setattr(shape, "tables", lambda problem: {})
+    monkeypatch.setattr(fit_warnings, "tables", lambda problem: {})
     unused = SimpleNamespace(density=SimpleNamespace(problem=None))
     table = pd.DataFrame(np.eye(2), [*NAMES], [*NAMES])
-    assert [*shape.shape_warnings(unused, None, None)] == []
-    assert [*shape.shape_warnings(unused, None, JointLaplace({}, table, 0.0))] == []
-    monkeypatch.setattr(shape, "tables", lambda problem: {"table": []})
+    assert [*fit_warnings.shape_warnings(unused, None, None)] == []
+    assert [*fit_warnings.shape_warnings(unused, None, JointLaplace({}, table, 0.0))] == []
+    monkeypatch.setattr(fit_warnings, "tables", lambda problem: {"table": []})
     unknown = replace(JointLaplace({}, table, 0.0), covariance=table * np.nan)
-    assert [*shape.shape_warnings(unused, None, unknown)] == []
+    assert [*fit_warnings.shape_warnings(unused, None, unknown)] == []

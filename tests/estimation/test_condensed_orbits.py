@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
-from bayesperiodic.density.condensed_orbits import near_data, shown_displacements
 from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.estimation.climbs import near_data, shown_displacements
 from bayesperiodic.periodic import condensed_batch
 from tests.periodic.test_condensed import FORCE, FREQUENCY, SAMPLES, VALUES, beam, solved
 
