@@ -37,7 +37,7 @@ from bayesperiodic.problem.description import Description
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
 # Factor of the errors of condensed solves in climbs that lead to the neighbourhood of an optimum.
-COARSENESS = 100.0
+COARSENESS = 1000.0
 # Points from which on solves without internal states are worth such climbs.
 MANY_POINTS = 256
 # Gain of a step in units of the square of the least one [standard deviations] that ends such a climb: far from the data

@@ -78,6 +78,8 @@ LEAST_NORMAL = 4.0
 INFORMED = 0.01
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
 MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
+# Ratio of the moves of two linearisations below which one step is taken between the next two.
+QUICKLY_SMALLER = 0.5
 
 
 @in_one_thread
@@ -275,6 +277,7 @@ def _first_end(objective: Objective, first: Iterate, near_optimum: bool, fewest:
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
     """Return problem and end of the climb with errors of inputs and frequencies, linearised about the estimate."""
+    most, sizes = STEPS_BETWEEN, [np.inf]
     for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs or problem.frequency_errors else 0):
         now, before = end.iterate, problem.input_errors
         orbits = now.here.solver.solutions(now.theta, sensitivities=False)
@@ -284,12 +287,15 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         objective, first = of_problem(problem, now)
         if first is None:
             break
-        end = climbed(objective, first, progress, STEPS_BETWEEN)
+        end = climbed(objective, first, progress, most)
         step = end.iterate.theta - now.theta
         moved = [one.expected - (before[n].expected if n in before else np.inf) for n, one in errors.items()]
         still = all(np.abs(change).max(initial=0.0) < SETTLED_INPUTS for change in moved)
         with np.errstate(invalid="ignore"):  # of a Hessian that overflows: not settled
             size = step @ objective.hessian_and_gradient(end.iterate)[0] @ step
+        # Further steps of a climb are not worth it as long as the next linearisation moves the estimate by more.
+        sizes.append(size)
+        most = 1 if size < QUICKLY_SMALLER**2 * sizes[-2] else STEPS_BETWEEN
         if still and size < SETTLED_INPUTS**2:
             return problem, resumed(objective, end) or end
     if problem.noisy_inputs or problem.frequency_errors:

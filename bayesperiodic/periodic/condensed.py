@@ -23,6 +23,7 @@ import numpy as np
 from bayesperiodic._linalg import unwarned
 from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
+from bayesperiodic.periodic.condensed_load import with_raised_load
 from bayesperiodic.periodic.element_forces import (
     Forces,
     Preconditioner,
@@ -59,10 +60,6 @@ MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40
 ROUNDING_OF_MEMORY = 1e-8
 # Residual, in units of its largest term, below which corrections with a fixed matrix are tried before Newton's step.
 NEAR_SOLUTION = 0.1
-# Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
-# the last one, and the smallest cosine between two tangents.
-FIRST_LOAD_STEP, SMALLEST_LOAD_STEP, LARGEST_LOAD_STEP = 0.05, 1e-6, 0.1
-MOST_LOAD_CORRECTIONS, LOAD_CONTRACTION, LOAD_ERROR, STRAIGHT_TANGENTS = 10, 0.6, 1e-7, 0.9
 
 
 @dataclass(frozen=True)
@@ -269,36 +266,40 @@ class CondensedEquations(PeriodicEquations):
     @unwarned
     def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any, halvings: int = MOST_STEP_HALVINGS) -> Solved:
         """Run Newton's iteration from a guess (points, elements) on its grid, each step halved so often at most."""
-        d, code, history = self._newton(parameters, harmonics(guess), 1.0, None, halvings)
+        d, code, history = self.newton(parameters, harmonics(guess), halvings=halvings)[:3]
         return Solved(on_grid(d, len(guess)), code, history)
 
-    def _newton(
-        self, parameters: np.ndarray, d: np.ndarray, load: float, given: ResponseMatrices | None,
-        halvings: int = MOST_STEP_HALVINGS,
-    ) -> tuple[np.ndarray, int, np.ndarray]:  # fmt: skip
+    def newton(
+        self, parameters: np.ndarray, d: np.ndarray, load: float = 1.0, halvings: int = MOST_STEP_HALVINGS,
+        known: Preconditioner | None = None,
+    ) -> tuple[np.ndarray, int, np.ndarray, Preconditioner | None]:  # fmt: skip
+        """Run Newton's iteration from harmonics d; return the last ones, the code, the history, and the matrix.
+
+        With internal states a matrix that is `known` from a solution near d, on any grid, serves for the first steps.
+        """
         points = 2 * len(d)
-        matrices = given or self.matrices(parameters, points)[0]
+        matrices = self.matrices(parameters, points)[0]
         free = load * times(matrices.d_u, self.input_harmonics(points))
         rates = self.rates(points)
         history: list[tuple[float, float, float]] = []
-        forces, known = self.forces(d, parameters), None
+        forces = self.forces(d, parameters)
         residual, size = residual_of(d, forces, matrices, free)
         for _ in range(MOST_CONDENSED_STEPS):
             if not np.isfinite(residual).all():
-                return d, NOT_FINITE, np.array(history).reshape(-1, 3)
+                return d, NOT_FINITE, np.array(history).reshape(-1, 3), known
             before = float(np.linalg.norm(residual))
             try:
-                if known is None or forces.memory is None:
+                if known is None or forces.memory is None or known.low > len(rates):
                     known = Preconditioner(forces, rates, matrices.d_f)
                 near = None
                 if before <= NEAR_SOLUTION * size:
                     near = corrected(self, parameters, d, forces, matrices.d_f, free, known)
                 if near is not None:
                     history.append((before / size, float(np.linalg.norm(near - d)) / size, 1.0))
-                    return near, CONVERGED, np.array(history)
+                    return near, CONVERGED, np.array(history), known
                 step, known = newton_step(forces, rates, matrices.d_f, residual, known)
             except np.linalg.LinAlgError:
-                return d, SINGULAR, np.array(history).reshape(-1, 3)
+                return d, SINGULAR, np.array(history).reshape(-1, 3), known
             share = 1.0
             for _ in range(halvings + 1):
                 there = d - share * step
@@ -311,13 +312,13 @@ class CondensedEquations(PeriodicEquations):
             else:
                 rounded = LAST_NEWTON_STEP if forces.memory is None else ROUNDING_OF_MEMORY
                 if before <= rounded * size:
-                    return d, CONVERGED, np.array(history).reshape(-1, 3)
-                return d, STALLED, np.array(history).reshape(-1, 3)
+                    return d, CONVERGED, np.array(history).reshape(-1, 3), known
+                return d, STALLED, np.array(history).reshape(-1, 3), known
             d, forces = there, new_forces
             history.append((before / size, float(np.linalg.norm(step)) / size, share))
             if share == 1.0 and (after <= NEWTON_ROUNDING * size or np.linalg.norm(step) <= LAST_NEWTON_STEP * size):
-                return d, CONVERGED, np.array(history)
-        return d, STALLED, np.array(history)
+                return d, CONVERGED, np.array(history), known
+        return d, STALLED, np.array(history), known
 
     @property
     def resolved_share(self) -> float:
@@ -331,29 +332,34 @@ class CondensedEquations(PeriodicEquations):
         if guess is not None:  # of which the last doubling is repeated
             points = max(points, 1 << (len(guess) // 2 - 1).bit_length())
         given = None if guess is None else harmonics(guess)
-        d, code, history, found_by = self._from(parameters, given, points)
+        d, code, history, known, found_by = self._from(parameters, given, points)
         while code != CONVERGED and points < MOST_STARTING_POINTS:  # few points may not resolve a contact
             points = min(STARTING_RATIO * points, MOST_STARTING_POINTS)
-            d, code, history, found_by = self._from(parameters, given, points)
+            d, code, history, known, found_by = self._from(parameters, given, points)
         if code == CONVERGED:
-            d, code, history = self.doubled(parameters, d)
+            d, code, history = self.doubled(parameters, d, known)
         return Solved(on_grid(d, 2 * len(d)), code, history), found_by
 
     def _from(
         self, parameters: np.ndarray, guess: np.ndarray | None, points: int
-    ) -> tuple[np.ndarray, int, np.ndarray, str]:
-        """Return a solution on a number of points from a guess (harmonics, elements) or rest, code, history, how."""
+    ) -> tuple[np.ndarray, int, np.ndarray, Preconditioner | None, str]:
+        """Return what `newton` does on a number of points from a guess (harmonics, elements) or rest, and how."""
         start = np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(guess, points)
-        d, code, history = self._newton(parameters, start, 1.0, None)
-        if code != CONVERGED and guess is None:
-            raised = self._raise_load(parameters, start)
+        solved = self.newton(parameters, start)
+        if solved[1] != CONVERGED and guess is None:
+            raised = with_raised_load(self, parameters, start)
             if raised is not None:
-                return *self._newton(parameters, raised, 1.0, None), "input amplitude"
-        return d, code, history, "newton"
+                return *self.newton(parameters, raised), "input amplitude"
+        return *solved, "newton"
 
     @unwarned
-    def doubled(self, parameters: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
-        """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
+    def doubled(
+        self, parameters: np.ndarray, d: np.ndarray, known: Preconditioner | None = None
+    ) -> tuple[np.ndarray, int, np.ndarray]:
+        """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history.
+
+        `known` is a matrix as that of `newton`.
+        """
         history, change = np.empty((0, 3)), np.nan
         before, share = self._outputs(d, parameters)
         enough = RESOLVED_CHANGE_OF_MEMORY if self.model.state_owners else RESOLVED_CHANGE
@@ -361,7 +367,7 @@ class CondensedEquations(PeriodicEquations):
             if 2 * len(d) >= MOST_ELEMENT_POINTS:
                 worst = np.fmax(change, share)
                 return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history
-            finer, code, history = self._newton(parameters, resized(d, 4 * len(d)), 1.0, None)
+            finer, code, history, known = self.newton(parameters, resized(d, 4 * len(d)), known=known)
             if code != CONVERGED:
                 return d, code, history
             d, (after, share) = finer, self._outputs(finer, parameters)
@@ -374,58 +380,6 @@ class CondensedEquations(PeriodicEquations):
         sizes = np.abs(self.input_harmonics(2 * self.grid.points)).max(axis=1, initial=0.0)
         highest = int(np.flatnonzero(sizes > LEAST_HARMONIC * sizes.max(initial=0.0)).max(initial=0))
         return max(FEWEST_ELEMENT_POINTS, 1 << (4 * highest).bit_length())
-
-    def _raise_load(self, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
-        """Follow the branch of solutions d while the load grows from zero, through folds; None if that fails."""
-        points = 2 * len(start)
-        matrices, rates = self.matrices(parameters, points)[0], self.rates(points)
-        full = times(matrices.d_u, self.input_harmonics(points))
-        d, code, _ = self._newton(parameters, start, 0.0, matrices)
-        load, unit, step = 0.0, float(np.linalg.norm(full)), FIRST_LOAD_STEP
-        if code != CONVERGED or not unit > 0.0:
-            return None
-
-        def corrected(d: np.ndarray, load: float, along: np.ndarray) -> tuple[np.ndarray, float, np.ndarray, bool]:
-            """Return the solution in the plane across a direction, and the tangent there."""
-            size = np.inf
-            for _ in range(MOST_LOAD_CORRECTIONS):
-                forces = self.forces(d, parameters)
-                inverse = Preconditioner(forces, rates, matrices.d_f)
-                residual, _ = residual_of(d, forces, matrices, load * full)
-                by_residual, by_load = _stacked(inverse(residual), unit), _stacked(inverse(full), unit)
-                change = along[:-1] @ by_residual / (along[:-1] @ by_load + along[-1])
-                move, last = _unstacked(change * by_load - by_residual, unit, d.shape), size
-                d, load, size = d + move, load + change, float(np.hypot(np.linalg.norm(move) / unit, change))
-                if not size < LOAD_CONTRACTION * last:
-                    break
-                if size < LOAD_ERROR:
-                    return d, load, np.append(by_load, 1.0), True
-            return d, load, along, False
-
-        try:
-            _, _, before, good = corrected(d, load, np.append(np.zeros(2 * d.size), 1.0))
-        except np.linalg.LinAlgError:
-            return None
-        before /= np.linalg.norm(before)
-        while good or step >= SMALLEST_LOAD_STEP:
-            try:
-                there, at, tangent, good = corrected(
-                    d + _unstacked(step * before[:-1], unit, d.shape), load + step * before[-1], before
-                )
-            except np.linalg.LinAlgError:
-                return None
-            tangent = tangent / np.linalg.norm(tangent)
-            turn = float(tangent @ before)
-            if not good or abs(turn) < STRAIGHT_TANGENTS:
-                step *= 0.5
-                if step < SMALLEST_LOAD_STEP:
-                    return None
-                continue
-            if at >= 1.0:
-                return d + (1.0 - load) / (at - load) * (there - d)
-            d, load, before = there, at, tangent * np.sign(turn)
-            step = min(1.5 * step, LARGEST_LOAD_STEP * (1.0 + float(np.linalg.norm(there)) / unit))
-        return None
 
     def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the outputs on the experiment's grid, and the bound of their error by the number of points."""
@@ -583,15 +537,6 @@ def receptance(model: CondensedModel) -> Receptance:
         columns = np.array([*given.weights, *given.inputs.values()])
         _RECEPTANCES[model] = Receptance(given, model.parameters, rows, columns)
     return _RECEPTANCES[model]
-
-
-def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:
-    return np.concatenate([amplitudes.real.ravel(), amplitudes.imag.ravel()]) / unit
-
-
-def _unstacked(vector: np.ndarray, unit: float, shape: tuple[int, ...]) -> np.ndarray:
-    real, imaginary = np.split(vector * unit, 2)
-    return (real + 1j * imaginary).reshape(shape)
 
 
 def equations_for(model: Model, inputs: Mapping[str, np.ndarray] | None, **settings: Any) -> PeriodicEquations:

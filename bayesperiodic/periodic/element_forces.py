@@ -25,6 +25,8 @@ SMALL_MATRIX = 64
 # Size of a matrix beyond which its factors serve for few corrections, these, and their largest ratio.
 LARGEST_INVERSE, MOST_FACTOR_CORRECTIONS, FACTOR_CORRECTION_RATE = 400, 12, 0.3
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
+# Ratio of two corrections below which the next one is estimated.
+FAST_SWEEPS = 0.1
 # Relative size below which corrections that do not become smaller are rounding errors. While an element sticks, its
 # internal state hardly forgets, and errors add up over the periods that it remembers.
 ROUNDED_SWEEP = 1e-8
@@ -241,18 +243,16 @@ def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
     They are (elements, harmonics, harmonics), the latter those of d, of as many low harmonics. Fewer points than those
     of the forces suffice.
     """
-    memory, result = memory.on_fewer(LEAST_PRECONDITIONER_POINTS * low), []
-    points = len(memory.states)
-    for unit in (1.0, 1j):
-        columns = np.zeros((2, points // 2, low), dtype=complex)
-        numbers = np.arange(low)
-        columns[0, numbers, numbers] = unit
-        columns[1, numbers, numbers] = 1j * rates[:low] * unit
-        d, v = (np.repeat(part[:, None], memory.elements, axis=1) for part in on_grid(columns, points))
-        change = memory.along(d, v)
-        by_harmonic = harmonics(change.reshape(points, -1))[:low].reshape(low, memory.elements, low)
-        result.append(by_harmonic.transpose(1, 0, 2))
-    return result
+    memory = memory.on_fewer(LEAST_PRECONDITIONER_POINTS * low)
+    points, elements = len(memory.states), memory.elements
+    turns = np.exp(2j * np.pi * np.arange(points) / points)
+    waves = 2.0 * turns[np.outer(np.arange(points), np.arange(low)) % points]
+    waves[:, 0] = 1.0
+    columns = np.concatenate([waves, 1j * waves], axis=1)
+    turning = 1j * np.tile(rates[:low], 2) * columns
+    d, v = (np.broadcast_to(part.real[:, None], (points, elements, 2 * low)) for part in (columns, turning))
+    by_harmonic = harmonics(memory.along(d, v).reshape(points, -1))[:low].reshape(low, elements, 2, low)
+    return [*by_harmonic.transpose(2, 1, 0, 3)]
 
 
 def newton_step(
@@ -337,7 +337,9 @@ def _swept(
         size, length = float(np.linalg.norm(x)), float(np.linalg.norm(step))
         if not np.isfinite(size):
             return None
-        if length <= last * size or before <= length <= ROUNDED_SWEEP * size:
+        # Where corrections become small fast, the next one is smaller than this by the same ratio.
+        left = length * length / before if length < FAST_SWEEPS * before < np.inf else length
+        if left <= last * size or before <= length <= ROUNDED_SWEEP * size:
             return x
         before = length
     return None

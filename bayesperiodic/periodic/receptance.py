@@ -200,7 +200,10 @@ class Receptance:
             diagonals, rows, columns = self._modes
             inverse, shape = 1.0 / (factors @ diagonals), (len(rates), len(rows), len(columns))
             values = (inverse @ self._products).reshape(shape)
-            changes = [-(inverse**2 * (s @ diagonals) @ self._products).reshape(shape) for s in slopes]
+            changes = [
+                -(inverse**2 * (s @ diagonals) @ self._products).reshape(shape) if s.any() else np.zeros(shape, complex)
+                for s in slopes
+            ]
         else:
             stiffness = np.tensordot(factors, self._matrices, (1, 0))
             right = np.linalg.solve(stiffness, np.broadcast_to(self._columns.T, (len(rates), *self._columns.T.shape)))

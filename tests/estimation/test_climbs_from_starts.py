@@ -58,7 +58,7 @@ def test_condensed_models_are_first_solved_coarsely_where_that_is_cheaper(monkey
     found, start = climbs.on_fewer_points(problem, np.ones(1))
     assert (found is not None, start is not None) == (coarse, precise) and (start is first or owners)
     if coarse:
-        assert found.equations == {"run": (1.0, 100.0), "two": (2.0, 100.0)}
+        assert found.equations == {"run": (1.0, 1000.0), "two": (2.0, 1000.0)}
         assert seen == [{"input_errors": None, "anchors": None}]
     stand_ins(monkeypatch, tables=lambda one: {"table": []})
     assert climbs.on_fewer_points(problem, np.ones(1)) == (None, None)

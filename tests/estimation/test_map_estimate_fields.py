@@ -154,7 +154,7 @@ def linearised(monkeypatch, reached, finite=lambda count: True):
         return SimpleNamespace(errors={"run": SimpleNamespace(expected=expected)})
 
     def climbed(objective, first, progress, most):
-        assert (objective, progress, most) == (curved, "bar", 5)
+        assert (objective, progress) == (curved, "bar") and most in (1, 5)
         return end([reached(len(calls))[0]])
 
     curved = SimpleNamespace(hessian_and_gradient=lambda iterate: (np.array([[4.0]]), None))
@@ -190,6 +190,21 @@ def test_errors_of_inputs_are_linearised_until_both_settle(monkeypatch, theta, e
     about = [4.0, *(3.0 + theta**n for n in range(1, rounds))]
     assert [call[1] for call in calls] == pytest.approx(about)
     assert calls[0][2] == (4.0, ("orbits", False), "measured")
+
+
+@pytest.mark.parametrize(("ratio", "later"), [(0.45, 1), (0.55, 5)])
+def test_one_step_is_taken_between_linearisations_whose_moves_are_halved_each_time(monkeypatch, ratio, later):
+    """The moves of θ shrink by a constant ratio; of the first there is none before."""
+    linearised(monkeypatch, lambda n: (3.0 + ratio**n, 2.0))
+    climbed, taken = map_estimate.climbed, []
+
+    def counted(objective, first, progress, most):
+        taken.append(most)
+        return climbed(objective, first, progress, most)
+
+    monkeypatch.setattr(map_estimate, "climbed", counted)
+    map_estimate._with_noisy_inputs(WithErrors(), end([4.0]), "bar")
+    assert len(taken) > 10 and taken == [5, 1, *[later] * (len(taken) - 2)]
 
 
 @pytest.mark.parametrize(
