@@ -154,7 +154,6 @@ def test_a_tail_in_many_dimensions_is_covered_along_its_direction():
     """Logarithms of gamma variates, which have a tail exp(0.5 x), among normal ones, turned at random.
 
     The component has mean and covariance of the draws, but three times the sd along the tail.
-
     """
     random, dimension, count = np.random.default_rng(4), 20, 20_000
     plain = random.standard_normal((count, dimension))
