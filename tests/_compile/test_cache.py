@@ -377,11 +377,7 @@ def test_another_processor_gets_an_entry_of_its_own(folder, monkeypatch, what):
 
 
 def test_four_processes_that_start_with_an_empty_cache_build_each_entry_once(folder):
-    program = """
-from bayesperiodic._compile import cache
-from tests._compile.test_cache import SMALL
-print(cache.load(SMALL).four_times(1.5))
-"""
+    program = f"from bayesperiodic._compile import cache; print(cache.load({SMALL!r}).four_times(1.5))"
     command = [sys.executable, "-W", "error::RuntimeWarning", "-c", program]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
     processes = [subprocess.Popen(command, **pipes) for _ in range(4)]

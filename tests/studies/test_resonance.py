@@ -10,6 +10,7 @@ from studies.__main__ import main
 from studies.resonance import calibration, systems
 
 
+@pytest.mark.slow
 def test_quick_run_makes_posteriors_of_all_kinds_and_is_faster_than_free_delays(tmp_path):
     folder = tmp_path / "resonance"
     assert main(["resonance", "--quick", "--out", str(folder)]) == 0

@@ -122,6 +122,7 @@ def test_the_measured_silverbox(tmp_path, capsys):
     assert all(path.stat().st_size <= 200_000 for path in tmp_path.glob("*.png"))
 
 
+@pytest.mark.slow
 @real_data
 @pytest.mark.filterwarnings("ignore:The noise of the measured inputs")
 def test_estimates_of_the_measured_silverbox_by_an_independent_route():
@@ -131,7 +132,7 @@ def test_estimates_of_the_measured_silverbox_by_an_independent_route():
 
     (recording, _), _ = silverbox.read_steady_parts(None, 1)
     experiment = silverbox.fold(recording, silverbox.SAMPLES)
-    fit = bp.map_estimate(silverbox.problem(experiment))
+    fit = bp.map_estimate(silverbox.problem(experiment), checks=False, progress=False)
     drive, response = (
         np.reshape(signal, (silverbox.PERIODS, -1)).mean(axis=0)
         for signal in (recording.inputs["drive"], recording.outputs["response"])
