@@ -17,17 +17,17 @@ def autoregressive(coordinates, generator):
 
 
 def test_twenty_coordinates_pass_where_one_does():
-    """Of 12 sets of 20 equal coordinates, 51 and 64 times their time long, at most four fail.
+    """Of six sets of 20 equal coordinates, 51 and 64 times their time long, at most two fail.
 
     The longest of 20 estimates changes by 2.2 % (one sd), so 2.3 % of sets change by more than 5 %: false-alarm rate
-    1e-5. The largest change of the 20, 6.5 % on average, would fail in nine sets of ten.
+    2e-4. The largest change of the 20, 6.5 % on average, would fail in nine sets of ten, and be missed in 0.1 %.
     """
     generator, names, failed = np.random.default_rng(5), [f"p{k}" for k in range(20)], 0
-    for _ in range(12):
+    for _ in range(6):
         chains = autoregressive(20, generator)
         before, now = (autocorrelation_time(chains[:, :steps]) for steps in STEPS)
         failed += bool(unmet_criteria(chains, now, before, names))
-    assert failed <= 4
+    assert failed <= 2
 
 
 def test_longest_time_that_grows_is_not_known():
