@@ -1,3 +1,4 @@
+import gc
 import signal
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
@@ -34,6 +35,7 @@ def pytest_collection_finish(session):
         for states, stencil in COMMON[int(worker["workerid"][2:]) :: worker["workercount"]]:
             for name in ("adjoint", "autonomous"):
                 compiled.kernels(name, states, stencil)
+    gc.freeze()  # the tests and all modules, in which the collector would look for garbage again and again
 
 
 @pytest.fixture(scope="session", autouse=True)
