@@ -17,7 +17,7 @@ def wrong():
     time = np.arange(10 * 64) / 64
     u = np.cos(2 * np.pi * time)
     y = 2.0 * u + 1.0 + 0.3 * np.cos(4 * np.pi * time) + 0.05 * np.random.default_rng(1).standard_normal(time.size)
-    run = bp.Recording.from_arrays(time, {"y": y}, {"u": u}).fold(frequency=1.0, harmonics={"y": 8})
+    run = bp.Recording.from_arrays(time, {"y": y}, {"u": u}).fold(64, frequency=1.0, harmonics={"y": 8})
     priors = {"a": bp.LogNormal(1.0, 2.0), "b": bp.Normal(0.0, 10.0)}
     problem = bp.Problem(GAIN, [run], priors=priors, scheme="fourier", input_noise="exact")
     fit = bp.map_estimate(problem, progress=False)
