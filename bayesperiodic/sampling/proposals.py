@@ -260,10 +260,11 @@ def with_tail(mixture: StudentMixture, points: np.ndarray) -> StudentMixture:
     (J.-F. Cardoso, Source separation using higher order moments, ICASSP 1989, 2109-2112).
     """
     straight = mixture.straightened(points)
-    mean, factor = straight.mean(axis=0), np.linalg.cholesky(np.cov(straight.T))
+    _, mean, covariance = normal_mixture(straight, 1)
+    factor = np.linalg.cholesky(covariance[0])
     white = np.linalg.solve(factor, (straight - mean).T)
     heaviest = np.linalg.eigh((white * np.sum(white**2, axis=0)) @ white.T)[1][:, -1]
-    wider = factor @ (np.eye(len(mean)) + (TAIL_FACTOR - 1.0) * np.outer(heaviest, heaviest))
+    wider = factor @ (np.eye(len(factor)) + (TAIL_FACTOR - 1.0) * np.outer(heaviest, heaviest))
     triangular = np.linalg.qr(wider.T)[1].T
     return StudentMixture(
         np.append((1.0 - TAIL_WEIGHT) * mixture.weights, TAIL_WEIGHT),

@@ -177,6 +177,14 @@ def test_a_tail_in_many_dimensions_is_covered_along_its_direction():
     assert after < 0.5 * before
 
 
+def test_a_tail_in_one_dimension_is_wider_than_the_draws():
+    draws = np.random.default_rng(5).standard_normal((400, 1))
+    tailed = with_tail(mixture(0.0), draws)
+    assert tailed.means[-1, 0] == pytest.approx(draws.mean())
+    assert tailed.factors[-1, 0, 0] == pytest.approx(3.0 * draws.std(), rel=1e-5)
+    assert tailed.weights.tolist() == pytest.approx([0.9, 0.1])
+
+
 def test_curvature_of_draws_is_found_and_the_mixture_follows_it():
     """The density is N(u₀; u₁² − 2u₁u₂, 0.1) N(u₁) N(u₂)."""
     fitted = fit_mixture(curved(1500, 1))
