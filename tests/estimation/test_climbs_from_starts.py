@@ -101,7 +101,7 @@ def test_an_iterate_of_another_problem_is_solved_again_from_its_orbits(monkeypat
 
     stand_ins(
         monkeypatch, LogPosterior=Density,
-        objective_near=lambda problem, near: SimpleNamespace(near=near, iterate=lambda here, noise: (here, noise)),
+        objective_near=lambda problem, near: SimpleNamespace(near=near, iterate=lambda *given, all_shapes: given),
     )  # fmt: skip
     solver = SimpleNamespace(problem="same", carried=lambda problem, theta: ("carried", problem, theta.tolist()))
     one = iterate([1.0], solver=solver)

@@ -51,7 +51,7 @@ class Fake:
         """Return the same point."""
         return iterate
 
-    def iterate(self, here, noise):
+    def iterate(self, here, noise, *, all_shapes):
         """Return the point at `here`, None if that is None."""
         return here and self.start(*here)
 

@@ -255,9 +255,9 @@ def test_error_without_a_laplace_approximation_names_the_alternative(known_varia
             bp.sample(problem, lost, seed=1, **PAIR)
 
 
-@pytest.mark.parametrize(("slow", "burn_in"), [(None, 50), (8, 100), (11, 250)])
+@pytest.mark.parametrize(("slow", "burn_in"), [(None, 50), (10, 100), (13, 250)])
 def test_burn_in_starts_again_if_slow_moves_are_expected_at_the_draws_kept(known_variance, monkeypatch, slow, burn_in):
-    """Times expected of the mixture are stated: the checks at 100, 150, 200 and 250 steps are the 8th to the 11th."""
+    """Times expected of the mixture are stated: the checks at 100, 150, 200 and 250 steps are the 10th to the 13th."""
     asked = []
 
     def stated(*_):
