@@ -19,6 +19,7 @@ FLAT = 1e-11
 # Shapes of a spectrum that are tried between two quantiles of their priors, of its first parameter and of any other.
 TRIED_FIRST, TRIED_OTHERS, TRIED_TAIL = 25, 3, 5e-4
 TRIED_VARIANCES = np.linspace(-6.0, 6.0, 13)  # logarithms of factors
+SMALLER_VARIANCE = 0.2
 
 
 def estimate_noise(
@@ -82,31 +83,37 @@ def _best_of(
 ) -> np.ndarray:
     """Return the best of the noise parameters (names,) near a start and of those from a grid of shapes.
 
-    The grid is over the shape and variance of one group of blocks after the other.
+    The grid is over the shape of one group of blocks after the other. The variance at each shape is the best of a list
+    without errors of the inputs, which would be costly, or a smaller one, as of such errors.
     """
 
-    def density(values: np.ndarray) -> np.ndarray:
-        return part(residuals, values, log_variance_factor) + part.log_prior(values, of_total=of_total)
+    def density(values: np.ndarray, likelihood: Likelihood = part) -> np.ndarray:
+        prior = likelihood.log_prior(values, of_total=of_total)
+        return np.asarray(likelihood(residuals, values, log_variance_factor) + prior)
 
-    best = near
+    best, plain = near, Likelihood(part.model, part.blocks, part.fixed)
     for group, members in part.groups():
-        columns = [k for k, name in enumerate(part.names) if name in group and name in part.free]
-        priors = [part.model.shape_priors.get(part.names[k].partition("[")[0]) for k in columns]
-        if not any(priors) or not all(part.blocks[b].spectral for b in members):
+        free = [k for k, name in enumerate(part.names) if name in group and name in part.free]
+        kinds = {k: part.names[k].partition("[")[0] for k in free}
+        shaped = [k for k in free if kinds[k] in part.model.shape_priors]
+        scales = [k for k in free if k not in shaped]
+        if not shaped or not all(part.blocks[b].spectral for b in members):
             continue
-        axes, count = [], TRIED_FIRST
-        for k, prior in zip(columns, priors, strict=True):
-            if prior is None:
-                axes.append(centre[k] * np.exp(TRIED_VARIANCES))
-                continue
-            ends = np.log(prior.quantile(np.array([TRIED_TAIL, 1.0 - TRIED_TAIL])))
-            axes.append(np.exp(np.linspace(ends[0], ends[1], count)))
-            count = TRIED_OTHERS
-        grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=-1)
-        tried = np.tile(best, (len(grid), 1))
-        tried[:, columns] = grid
-        values = np.concatenate([density(some) for some in np.array_split(tried, TRIED_FIRST)])
-        there = _maximise(part, residuals, tried[np.argmax(values)], centre, log_variance_factor, of_total)
+        axes: list[np.ndarray] = []
+        for k in shaped:
+            ends = np.log(part.model.shape_priors[kinds[k]].quantile(np.array([TRIED_TAIL, 1.0 - TRIED_TAIL])))
+            axes.append(np.exp(np.linspace(ends[0], ends[1], TRIED_OTHERS if axes else TRIED_FIRST)))
+        shapes = np.tile(best, (TRIED_FIRST * TRIED_OTHERS ** (len(shaped) - 1), 1))
+        shapes[:, shaped] = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=-1)
+        several = np.repeat(shapes[None], len(TRIED_VARIANCES), axis=0)
+        several[..., scales] = centre[scales] * np.exp(TRIED_VARIANCES)[:, None, None]
+        chosen = np.argmax([density(each, plain) for each in several], axis=0)
+        tried = several[chosen, np.arange(len(shapes))]
+        if part.shared:
+            smaller = tried.copy()
+            smaller[:, scales] *= SMALLER_VARIANCE
+            tried = np.concatenate([tried, smaller])
+        there = _maximise(part, residuals, tried[np.argmax(density(tried))], centre, log_variance_factor, of_total)
         best = max(best, there, key=density)
     return best
 
