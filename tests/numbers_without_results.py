@@ -20,7 +20,8 @@ WITHOUT_RESULTS = {
         UNSTORED: (
             "(AMD EPYC, Zen 5)", "took 1.2 to 1.4 times as long as here", "missed there by 12 to 33 %",
             "some 45 functions of the solver, in two processes of some 4 s each",
-            "time is spread over 8,950 tests", "those of 8,950; the 11,616 of later", "took 791 s with a full cache", "takes 15 s of one core once per machine", "64 walkers at once |",
+            "time is spread over 8,950 tests", "those of 8,950; the 11,616 of later", "took 791 s with a full cache",
+            "takes 15 s of one core once per machine", "64 walkers at once |",
             "Duffing | 1 | 160 | 0.93 | 1.2", "Duffing, folded | 1 | 800 | 1.1 | 2.0", "damper | 1 | 1600 | 1.2 | 2.3",
             "gear, force | 2 | 800 | 1.8 | 1.8", "gear, force, folded | 2 | 800 | 1.9 | 2.4",
             "van der Pol | 1 | 200 | 1.0 | 1.1", "coupled van der Pol | 2 | 200 | 1.0 | 1.6",

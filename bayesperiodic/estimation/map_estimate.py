@@ -40,6 +40,7 @@ from bayesperiodic.estimation.covariance import (
 )
 from bayesperiodic.estimation.fit_warnings import second_order_warnings, shape_warnings, table_warnings
 from bayesperiodic.estimation.gauss_newton import (
+    MAX_STEP_HALVINGS,
     MAX_STEPS,
     End,
     Iterate,
@@ -80,6 +81,8 @@ INFORMED = 0.01
 MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
 # Ratio of the moves of two linearisations below which one step is taken between the next two.
 QUICKLY_SMALLER = 0.5
+# Halvings of a step to an estimate that is near: shorter ones lead to parameters at which an orbit ends.
+FEWER_HALVINGS = 8
 
 
 @in_one_thread
@@ -235,14 +238,15 @@ def map_estimate(
 def end_from(problem: Problem, theta: np.ndarray) -> End | None:
     """Return the end of the climb from a start (names,); None if the density is not finite.
 
-    It is near the estimate: without the bias correction of the variances, and without other optima.
+    It is near the estimate: without the bias correction of the variances, and without other optima. A climb that needs
+    short steps ends as "stalled": it leads away from the orbits.
     """
     coarse, precise = on_fewer_points(problem, theta)
     near_optimum = coarsely(problem, coarse, theta, False)
     first = near_optimum or precise or first_iterate(problem, theta)
     if first is None:
         return None
-    end = _first_end(objective_near(problem, first.here), first, near_optimum is not None, 1, False)
+    end = _first_end(objective_near(problem, first.here), first, near_optimum is not None, 1, False, FEWER_HALVINGS)
     end = on_measured_orbits(problem, theta, end, False)
     if near_optimum:
         end = climbed(objective_near(problem, end.iterate.here), end.iterate, False)
@@ -263,14 +267,18 @@ def nearest_optimum(
     return None if first is None else (objective, climb(objective, first))
 
 
-def _first_end(objective: Objective, first: Iterate, near_optimum: bool, fewest: int, progress: bool) -> End:
+def _first_end(
+    objective: Objective, first: Iterate, near_optimum: bool, fewest: int, progress: bool,
+    halvings: int = MAX_STEP_HALVINGS,
+) -> End:  # fmt: skip
     """Return the end of the climb from the first start, of condensed models `near_optimum`, where that is enough.
 
     Where tests decide on more starts, they are of this neighbourhood; without such tests none is needed.
     """
     if near_optimum and fewest > 1:
         return rough(first)
-    end = climbed(objective, first, progress, least=SEPARATE_SDS if near_optimum else 0.0)
+    least = SEPARATE_SDS if near_optimum else 0.0
+    end = climbed(objective, first, progress, halvings=halvings, least=least)
     problem: Any = objective.density.problem
     return on_best_sheets(problem, end, progress)
 

@@ -259,14 +259,48 @@ def test_ends_are_moved_and_restated_for_another_objective(monkeypatch):
 )
 def test_the_first_end_is_climbed_to_unless_tests_decide_on_more_starts(monkeypatch, near, fewest, least):
     calls = []
-    monkeypatch.setattr(map_estimate, "climbed", lambda *given, least: calls.append((*given, least)) or "end")
+    monkeypatch.setattr(
+        map_estimate, "climbed", lambda *given, halvings, least: calls.append((*given, halvings, least)) or "end"
+    )
     monkeypatch.setattr(map_estimate, "on_best_sheets", lambda problem, one, bar: (problem, one, bar))
     objective = SimpleNamespace(density=SimpleNamespace(problem="problem"))
-    assert map_estimate._first_end(objective, "first", near, fewest, "bar") == ("problem", "end", "bar")
-    assert calls == [(objective, "first", "bar", least)]
+    assert map_estimate._first_end(objective, "first", near, fewest, "bar", 4) == ("problem", "end", "bar")
+    assert calls == [(objective, "first", "bar", 4, least)]
     first = end([1.0]).iterate
     rough = map_estimate._first_end(objective, first, True, 2, "bar")
     assert rough.iterate is first and len(calls) == 1
+
+
+def test_an_estimate_that_is_near_is_climbed_to_without_short_steps(monkeypatch):
+    """A step is halved 8 times and no more, and the climb from there ends."""
+    tried, here = [], SimpleNamespace(theta=np.zeros(1), noise=None, here=None, objective=0.0)
+
+    class Refused:
+        density = SimpleNamespace(problem=SimpleNamespace(joint_prior=SimpleNamespace(
+            widths=np.ones(1), median=lambda: np.zeros(1), supports={"a": (-np.inf, np.inf)}
+        )))  # fmt: skip
+
+        def hessian_and_gradient(self, iterate):
+            return np.eye(1), np.ones(1)
+
+        def longest(self, theta, step):
+            return 1.0
+
+        def moved(self, theta, step):
+            return theta + step
+
+        def at(self, theta, near, noise):
+            tried.append(float(theta[0]))
+
+    for name, value in {
+        "on_fewer_points": lambda problem, theta: (None, None), "coarsely": lambda *given: None,
+        "first_iterate": lambda problem, theta: here, "objective_near": lambda problem, near: Refused(),
+        "on_best_sheets": lambda problem, one, bar: one, "on_measured_orbits": lambda problem, theta, one, bar: one,
+        "_with_noisy_inputs": lambda problem, one, bar: (problem, one),
+    }.items():  # fmt: skip
+        monkeypatch.setattr(map_estimate, name, value)
+    assert map_estimate.end_from("problem", np.zeros(1)).status == "stalled"
+    assert tried == [0.5**k for k in range(8)]
 
 
 def refused(monkeypatch, given=True, excluding=(), statuses=None, blocked=None, experiments=1, **changes):
