@@ -66,11 +66,15 @@ def run(options: argparse.Namespace) -> None:
     runs = [beam.shifted(beam.experiment(orbit), *delays) for orbit in used]
     sections = [section_of([recording.aligned(one, delays) for one in part], frequency) for part in (fitted, left_out)]
     with watch.part("models", "models of several degrees, from the orbits one after the other"):
-        tried = [one for degree in (DEGREES[:2] if options.quick else DEGREES)
-                 if (one := fit_of(degree, used, runs, sections[0], options.seed)) is not None]  # fmt: skip
+        starts = {degree: beam.start_from(used, degree, COUPLING, delays=True, seed=options.seed)
+                  for degree in (DEGREES[:2] if options.quick else DEGREES)}  # fmt: skip
+        tasks = [(degree, start, runs, sections[0], options.seed) for degree, start in starts.items()]
+        tried = [one for one in common.each(fit_of, tasks, here=options.quick) if one is not None]
     best = simplest(tried)
     with watch.part("missing terms", "terms that this model, and that of the degree before, lack"):
-        lack = {one.degree: lacking(one) for one in tried if best.degree - 2 <= one.degree <= best.degree}
+        near = [one for one in tried if best.degree - 2 <= one.degree <= best.degree]
+        terms = common.each(lacking, [(one,) for one in near], here=options.quick)
+        lack = {one.degree: found for one, found in zip(near, terms, strict=True)}
     print(f"  missing: {lack}")
     problem, fit = best.estimate.problem, best.estimate.fit
     print(f"{best.estimate}\n  the force of degree {best.degree} is used")
@@ -209,10 +213,9 @@ def delays_of(orbits: list[bp.Orbit], seed: int) -> tuple[Delays, Delays]:
 
 
 def fit_of(
-    degree: int, orbits: list[bp.Orbit], runs: list[bp.Experiment], section: bp.PoincareSection, seed: int
+    degree: int, start: beam.Start, runs: list[bp.Experiment], section: bp.PoincareSection, seed: int
 ) -> Chosen | None:
     """Return the estimate with a restoring force of this degree, and its free runs; None without any orbit."""
-    start = beam.start_from(orbits, degree, COUPLING, delays=True, seed=seed)
     problem = bp.Problem(beam.model(degree, COUPLING), runs, priors=beam.priors_about(start))
     try:
         estimate = bp.estimate_orbits(problem, start=start.values, progress=False)
