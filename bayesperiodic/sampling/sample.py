@@ -156,7 +156,7 @@ def sample(
         approximation with five times its standard deviations.
     coordinates : "ridge" or "natural"
         "natural" takes no logarithms of parameters, to show why they are taken: along the ridge of a product standard
-        deviations were up to 5 % too small although the stop rule had passed, as walkers reach its tails slowly.
+        deviations were up to 8 % too small although the stop rule had passed, as walkers reach its tails slowly.
     variances : "sampled" or "collapsed"
         "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
         dimensions. Only with the prior 1/v or a flat one, for independent errors or circulant ones with fixed length
@@ -260,7 +260,7 @@ def sample(
     if posterior.converged and coordinates == NATURAL and problem.logarithmic.any():
         warnings.warn(
             "coordinates: 'natural' can miss the tails of a ridge although the stop rule has passed, which makes "
-            "standard deviations up to 5 % too small; compare with the default, 'ridge'.",
+            "standard deviations up to 8 % too small; compare with the default, 'ridge'.",
             UserWarning,
             stacklevel=3,
         )
